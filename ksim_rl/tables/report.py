@@ -87,18 +87,27 @@ def _mean_figures(
 
 
 def write(table: Table, rows: Mapping[str, Results], folder: Path, *, seeds: Sequence[int]) -> Path:
-    """Write `<folder>/<table>.json`, `.md` and, where a row is complete, `.png`; return the path of the first."""
+    """Write `<folder>/<table>.json`, `.md` and, where a row has a figure, `.png`; return the path of the first."""
     tree = _tree(table, rows, seeds)
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / f"{table.name}.json"
     # JSON for programs, Markdown for readers.
     write_whole(path, json.dumps(tree, indent=2) + "\n")
     write_whole(path.with_suffix(".md"), _markdown(table, rows, tree))
-    if rows:
+    # A level that no seed reaches has no place on an axis of seconds.
+    drawn = {
+        name: results
+        for name, results in rows.items()
+        if value_of(table.rows[name], results) is not None
+    }
+    if drawn:
         from ksim_rl.tables import picture  # Matplotlib takes half a second to import
 
         with whole_file(path.with_suffix(".png")) as temporary:
-            picture.draw(table, rows, temporary)
+            picture.draw(table, drawn, temporary)
+    else:
+        # The picture of figures that no longer count.
+        path.with_suffix(".png").unlink(missing_ok=True)
     return path
 
 

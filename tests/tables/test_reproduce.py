@@ -263,6 +263,7 @@ def test_a_row_whose_levels_no_seed_reaches_is_in_the_table(reproduce):
     code, _, table = reproduce("--rows", "ppo/Other", "--seeds", "1", text=text)
     assert code == 1 and table["figures"] == {"poles/ppo/Other/falls": 0.0}
     assert "not reached, falls 0.0 %" in (reproduce.folder / "poles.md").read_text()
+    assert not (reproduce.folder / "poles.png").exists(), "a picture of nothing"
 
 
 def test_what_training_ended_with_stands_beside_the_return_for_the_worst_seed(reproduce):
