@@ -52,7 +52,7 @@ class Field:
 
 @wp.struct
 class Prism:
-    """The ground below one triangle, with the outward normals of its sides and of its top, which `with_normals` sets."""
+    """The ground below one triangle, with the outward normals of its sides and its top, which `with_normals` sets."""
 
     a: wp.vec3
     b: wp.vec3

@@ -20,8 +20,8 @@ SHARED_FLOATS = 48 * 1024 // 4
 FLOATS_PER_WORLD = 5536
 FLOATS_OF_MANY = 5048
 # Where njmax alone takes that much, as of robots whose feet touch many prisms of a height field, fewer worlds live on a
-# multiprocessor anyway, and rows in shared memory count for more (H200, 4096 worlds of G1 with 162 rows in the mean, njmax
-# 840: 0.69 ms a solve with none of them there, 0.58 with 162, 0.54 with 322).
+# multiprocessor anyway, and rows in shared memory count for more (H200, 4096 worlds of G1 with 162 rows in the mean,
+# njmax 840: 0.69 ms a solve with none of them there, 0.58 with 162, 0.54 with 322).
 # A multiprocessor has 228 KiB of shared memory, of which each block takes another KiB, and in each quarter, where
 # warps stay, 512 registers for a lane. With 72 of them as many worlds of Go1 run in parallel as the memory lets, 28.
 # With 96 only 20 do, and fewer values lie in memory meanwhile, which is faster where most worlds run in parallel anyway
