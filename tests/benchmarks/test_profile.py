@@ -1,7 +1,8 @@
 import time
 
 from benchmarks import command_line
-from benchmarks.profile import Clock, by_room, measure
+from benchmarks.profile import Clock, Live, by_room, measure
+from ksim_rl.device.capture import Captured
 
 
 def test_a_room_is_charged_without_the_rooms_inside_it():
@@ -64,3 +65,12 @@ def test_an_iteration_of_a_compiled_step_is_laid_to_its_rooms():
     assert figures["terms_ms"] < figures["iteration_ms"] / 2, (
         "what is inside is not taken out of the rollout"
     )
+
+
+def test_what_is_profiled_runs_each_time_where_the_captured_does():
+    calls = []
+    captured = Captured(lambda: calls.append(1), device="cpu")
+    live = Live(captured)
+    live()
+    live()
+    assert len(calls) == 2 and live.device == captured.device
