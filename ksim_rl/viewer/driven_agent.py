@@ -30,7 +30,10 @@ class DrivenAgent(TensorDictModuleBase):
         names: list[str] = []
         for term, size in ours.action_manager.sizes.items():
             # A number behind the term's name only where there are several.
-            names += [term] if size == 1 else [f"{term}.{column}" for column in range(size)]
+            if size == 1:
+                names.append(term)
+            else:
+                names += [f"{term}.{column}" for column in range(size)]
         # A transform of the env may give the action another size.
         if len(names) != self._action_EL.shape[-1]:
             names = [str(column) for column in range(self._action_EL.shape[-1])]
