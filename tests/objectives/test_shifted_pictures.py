@@ -60,13 +60,13 @@ def test_ranks_move_the_rows_that_shards_of_one_process_have(monkeypatch):
     assert torch.equal(moved(depth_MB[:, 4:]), whole_MB[:, 4:])
 
 
-def test_a_shift_by_a_whole_picture_is_refused():
+def test_a_shift_by_more_than_a_picture_is_refused():
     shifted = ShiftedPictures({"depth": "HWC"}, pixels=7, minibatch=2)
-    shifted.check_shape("depth", (8, 9))
-    said = r"random_shift: 'depth': pixels=7: it takes pictures of at least 8 .* these have 7 x 9"
+    shifted.check_shape("depth", (7, 9))
+    said = r"random_shift: 'depth': pixels=7: it takes pictures of at least 7 .* these have 6 x 9"
     with pytest.raises(ValueError, match=said):
-        shifted.check_shape("depth", (7, 9))
-    rows = torch.rand(2, 7, 9)
+        shifted.check_shape("depth", (6, 9))
+    rows = torch.rand(2, 6, 9)
     with pytest.raises(ValueError, match=said):
         shifted.shift_(TensorDict({"depth": rows, "next": {"depth": rows}}, batch_size=[2]))
 

@@ -65,8 +65,7 @@ class RandomShift(PictureEffect):
         return 2
 
     def new_shape(self, shape: Sequence[int]) -> tuple[int, ...]:
-        # By as many nothing would be left of the picture but its edge.
-        _check_size("pixels", self.pixels + 1, shape, given=self.pixels)
+        _check_size("pixels", self.pixels, shape, given=self.pixels)
         return tuple(shape)
 
     def __call__(self, pictures_ENHWC: Pictures, draws_EK: Draws) -> Changed:
@@ -150,7 +149,7 @@ class Blur(Light):
         return max(1, math.ceil(3 * self.sigma[1]))
 
     def new_shape(self, shape: Sequence[int]) -> tuple[int, ...]:
-        _check_size("sigma", self._reach + 1, shape, given=self.sigma)
+        _check_size("sigma", self._reach, shape, given=self.sigma)
         return tuple(shape)
 
     def __call__(self, pictures_ENHWC: Pictures, draws_EK: Draws) -> Changed:

@@ -164,15 +164,15 @@ def test_settings_out_of_range_are_refused(effect, fields, message):
 @pytest.mark.parametrize(
     ("effect", "least"),
     [
-        (RandomShift(pixels=4), 5),
-        (Blur(sigma=(0.0, 2.0)), 7),
+        (RandomShift(pixels=4), 4),
+        (Blur(sigma=(0.0, 2.0)), 6),
         (CutOut(pixels=(2, 6)), 6),
         (DepthHoles(pixels=5), 5),
         (RandomCrop(height=5, width=3), 5),
     ],
 )
 def test_pictures_that_are_smaller_than_an_effect_are_refused(effect, least):
-    """A shift of n pixels leaves at least one of n + 1, and a blur reaches three standard deviations."""
+    """A shift is by one side at most, and so far does a blur reach, three standard deviations."""
     effect.new_shape((1, least, least + 3, 3))
     for too_small in ((1, least - 1, 20, 3), (2, 20, least - 1, 1)):
         if isinstance(effect, RandomCrop) and too_small[1] == 20:
