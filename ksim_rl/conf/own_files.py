@@ -1,7 +1,7 @@
 """Finds what a user's own config files say, so that an error about it names the file."""
 
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from importlib.resources import files
 from importlib.resources.abc import Traversable
@@ -41,7 +41,9 @@ def own_files() -> list[OwnFile]:
         if source.schema == "file":
             places.append(Path(source.path))
         elif source.schema == "pkg" and source.path not in NOT_OWN:
-            places.append(files(source.path))
+            # Hydra itself warns of a package that is not there.
+            with suppress(ModuleNotFoundError):
+                places.append(files(source.path.replace("/", ".")))
     # The primary config, then the choice of each group: "group" or "group@package".
     wanted = [(str(launched.job.config_name), "")]
     for group, choice in launched.runtime.choices.items():

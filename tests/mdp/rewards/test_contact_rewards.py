@@ -86,6 +86,23 @@ def test_self_collision_counts_the_substeps_of_a_hard_contact(make_bench):
     )
 
 
+def test_a_hit_that_is_over_before_the_last_substep_is_illegal_where_all_are_read(make_bench):
+    own = {
+        "subtrees": ("frame",),
+        "against": "frame",
+        "against_kind": "subtree",
+        "reduce": "strongest",
+    }
+    sensors = {name: ContactSensor(every_substep=name == "all", **own) for name in ("all", "last")}
+    bench = make_bench(HAMMER, 2, sensors)
+    # The one is pressed 3 cm deep and thrown up, and has left after seven of ten substeps; the other hovers.
+    bench.place(qpos=[[-0.03], [1.0]], qvel=[[0.6], [0.0]])
+    bench.step()
+    for sensor, ended in (("all", [True, False]), ("last", [False, False])):
+        term = mdp.IllegalContact(sensor=sensor, threshold=10.0)
+        assert bench.read(term, "terminations/x").tolist() == ended
+
+
 @pytest.mark.parametrize("term", [mdp.ContactForceAbove, mdp.UndesiredContacts, mdp.SelfCollision])
 def test_thresholds_must_not_be_negative(term):
     with pytest.raises(ValueError, match="threshold=-1"):
