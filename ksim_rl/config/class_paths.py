@@ -32,6 +32,12 @@ MOVED_CLASSES = {"ksim_rl.tasks.planar.PoseDistance": "ksim_rl.mdp"}
 GONE = {("SimCfg", "deterministic")}
 """Fields that earlier versions wrote into configs, by their class, and that nothing needs any more."""
 
+REPLACED = {
+    "GeneralActuator": "a <general> actuator in the robot's MJCF",
+    "RandomCommandCurriculum": "ksim_rl.mdp.CommandRangesByLevel",
+}
+"""Classes of 0.1 that are gone, and what to use instead."""
+
 
 def public_path(cls: type) -> str:
     """Return the shortest path that leads to a class, so that files which move inside a room change no config."""
@@ -93,6 +99,8 @@ def find(
             for name, value in vars(module).items()
             if isinstance(value, type) and accepts(value)
         ]
+    if package == OWN and class_name in REPLACED:
+        raise ValueError(f"{where}: {class_name} is gone: use {REPLACED[class_name]}")
     if isinstance(declined, type) and not accepts(declined):
         raise ValueError(
             f"{where}: {class_name} is a class, and no {kind}: name the {kind} that makes one, as docs/learning.md "

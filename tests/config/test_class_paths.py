@@ -98,6 +98,21 @@ def test_fields_that_are_gone_are_ignored_and_only_where_they_were():
         from_tree(ManagerBasedRlEnvCfg, {**tree, "deterministic": True})
 
 
+@pytest.mark.parametrize(
+    ("target", "instead"),
+    [
+        ("ksim_rl.envs.actuators.GeneralActuator", "a <general> actuator in the robot's MJCF"),
+        ("ksim_rl.envs.transforms.RandomCommandCurriculum", "ksim_rl.mdp.CommandRangesByLevel"),
+    ],
+)
+def test_a_class_of_0_1_that_is_gone_is_refused_with_what_to_use(target, instead):
+    name = target.rpartition(".")[2]
+    with pytest.raises(
+        ValueError, match=rf"^a\._target_='{target}': {name} is gone: use {instead}$"
+    ):
+        class_paths.find(target, "a", kind="dataclass", accepts=dataclasses.is_dataclass)
+
+
 def test_classes_that_the_command_line_could_not_load_are_noted():
     here, plugged = (
         {"_target_": "__main__.Mine"},
