@@ -3,6 +3,7 @@
 import ast
 import re
 from collections.abc import Callable, Collection
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -45,14 +46,20 @@ def named(title: str) -> list[tuple[str, str]]:
     return found
 
 
-def modules_that(is_call: Callable[[str], bool]) -> set[str]:
-    """Return the modules with a call whose text passes, such as `np.load`."""
-    found = set()
+@cache
+def calls() -> dict[str, set[str]]:
+    """Return the texts of functions that each module calls, such as `np.load`."""
+    found = {}
     for path in PACKAGE.rglob("*.py"):
-        for node in ast.walk(ast.parse(path.read_text())):
-            if isinstance(node, ast.Call) and is_call(ast.unparse(node.func)):
-                found.add(path.relative_to(PACKAGE).as_posix())
+        nodes = ast.walk(ast.parse(path.read_text()))
+        texts = {ast.unparse(node.func) for node in nodes if isinstance(node, ast.Call)}
+        found[path.relative_to(PACKAGE).as_posix()] = texts
     return found
+
+
+def modules_that(is_call: Callable[[str], bool]) -> set[str]:
+    """Return the modules with a call whose text passes."""
+    return {module for module, texts in calls().items() if any(map(is_call, texts))}
 
 
 def defined(file: str) -> Collection[str]:
