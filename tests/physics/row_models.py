@@ -110,17 +110,10 @@ def in_c(world: World, cone: str, row: int) -> tuple[mujoco.MjModel, mujoco.MjDa
 
 
 def permute_pool(world: World, seed: int) -> None:
-    """Put the contacts into other places of the pool; contacts of one pair keep their order."""
+    """Put the contacts into other places of the pool, as threads may that find them side by side."""
     d = world.warp_data_E
     count = int(d.nacon.numpy()[0])
-    geoms, worlds = d.contact.geom.numpy()[:count], d.contact.worldid.numpy()[:count]
-    groups: dict[tuple[int, ...], list[int]] = {}
-    for place in range(count):
-        groups.setdefault((worlds[place], *geoms[place]), []).append(place)
-    draws = np.random.default_rng(seed).random(count)
-    for places in groups.values():
-        draws[places] = np.sort(draws[places])
-    order = np.argsort(draws)
+    order = np.random.default_rng(seed).permutation(count)
     for array in vars(d.contact).values():
         if isinstance(array, wp.array) and array.shape[0] == d.naconmax:
             values = array.numpy().copy()

@@ -2,8 +2,9 @@
 // in their order, before the others by their geoms, of which each contact has the one of the lower type first
 // (engine_collision_driver.c).
 //
-// One thread writes the contacts of a pair one after another, so that their places in the pool are in its order. Only
-// contacts of signed distance fields are each written by another thread: these are ordered by where they are.
+// What writes the contacts of a pair numbers them in its order (geomcollisionid), as lanes of a warp that find them side
+// by side take places in the pool as they come. Only contacts of signed distance fields have no such numbers: these are
+// ordered by where they are.
 #pragma once
 #include "ksim_rl/device/lanes.cuh"
 
@@ -106,8 +107,7 @@ CUDA_CALLABLE inline bool precedes(const ListArguments& a, const mask64* keys, c
             if (a.contact_pos.data[one][i] != a.contact_pos.data[two][i])
                 return a.contact_pos.data[one][i] < a.contact_pos.data[two][i];
     }
-    // Pairs that are the same in all have contacts of several threads.
-    if (REPEATED_PAIRS && a.contact_geomcollisionid.data[one] != a.contact_geomcollisionid.data[two])
+    if (a.contact_geomcollisionid.data[one] != a.contact_geomcollisionid.data[two])
         return a.contact_geomcollisionid.data[one] < a.contact_geomcollisionid.data[two];
     return one < two;
 }
