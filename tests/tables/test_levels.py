@@ -106,6 +106,7 @@ GOOD = {
     "at_target",
     "forward_speed",
     "goals_reached",
+    "is_open",
     "stands",
     "stood_soon",
     "success",
