@@ -107,6 +107,7 @@ GOOD = {
     "forward_speed",
     "goals_reached",
     "is_open",
+    "is_open",
     "stands",
     "stood_soon",
     "success",
