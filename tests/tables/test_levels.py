@@ -107,7 +107,6 @@ GOOD = {
     "forward_speed",
     "goals_reached",
     "is_open",
-    "is_open",
     "stands",
     "stood_soon",
     "success",
