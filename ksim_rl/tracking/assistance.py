@@ -11,6 +11,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -132,13 +133,25 @@ def without_help(cfg: ManagerBasedRlEnvCfg, *, clip: str = "") -> ManagerBasedRl
 class RolloutRunner(TrialRunner):
     """Runs trials, and keeps the states of the robots in `qpos_TEL`: at the start, and after each env step."""
 
+    def __init__(self, base: ManagerBasedRlEnv, **parts: Any) -> None:
+        super().__init__(base, **parts)
+        now_EL = base.world.qpos_EL
+        self.qpos_TEL = now_EL.new_zeros((self.max_steps + 1, *now_EL.shape))
+        # On the device: a step is replayed as a graph, in which no Python counts.
+        self._frame_1 = torch.zeros(1, dtype=torch.int64, device=now_EL.device)
+
     def _start(self) -> None:
         super()._start()
-        self.qpos_TEL = [self._base.world.qpos_EL.clone()]
+        self._frame_1.zero_()
+        self._keep_state()
 
     def _count_one_step(self) -> None:
         super()._count_one_step()
-        self.qpos_TEL.append(self._base.world.qpos_EL.clone())
+        self._keep_state()
+
+    def _keep_state(self) -> None:
+        self.qpos_TEL.index_copy_(0, self._frame_1, self._base.world.qpos_EL[None])
+        self._frame_1.add_(1)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -210,8 +223,7 @@ def _best(
     error_E = runner.errors_EM[:, 0] / runner.length_E.clamp_min(1)
     best = int(torch.where(runner.ended_well_E, error_E, torch.inf).argmin())
     # The last step's state is that of the next start already.
-    frames = runner.qpos_TEL[: int(runner.length_E[best])]
-    qpos_FL = torch.stack([qpos_EL[best] for qpos_EL in frames]).double().cpu().numpy()
+    qpos_FL = runner.qpos_TEL[: int(runner.length_E[best]), best].double().cpu().numpy()
     return Rollout(
         qpos_FL=qpos_FL, fps=1.0 / base.step_dt, success=success, error=float(error_E[best])
     )

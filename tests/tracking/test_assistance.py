@@ -59,12 +59,12 @@ def rising(tmp_path_factory):
     return str(path)
 
 
-def cfg_of(motion, *, assist=None, limit=0.05):
+def cfg_of(motion, *, assist=None, limit=0.05, engine="c"):
     group = ObservationGroupCfg(terms={"pos": ObservationTermCfg(term=mdp.RootPos())})
     cfg = envs.ManagerBasedRlEnvCfg(
         decimation=4,
         scene=SceneCfg(robots={"box": MjcfRobot(source=BOX)}, num_envs=4),
-        sim=SimCfg(engine="c"),
+        sim=SimCfg(engine=engine),
         observations={"actor": group, "critic": group},
         actions={"arm": mdp.JointEffortAction(joints="arm")},
         events={"start": StartInMotion(file=motion, start_range=(0.0, 0.0))},
@@ -176,24 +176,29 @@ def still():
     )
 
 
-def run_cfg(task):
-    cfg = conf.compose(["task=walker_track", "device=cpu", "num_envs=4"])
+def run_cfg(task, device="cpu"):
+    cfg = conf.compose(["task=walker_track", f"device={device}", "num_envs=4"])
     return dataclasses.replace(cfg, task=task, task_name="box")
 
 
 @pytest.mark.full
-def test_what_a_policy_does_alone_is_a_motion_that_tracking_reads(rising, tmp_path):
+@pytest.mark.parametrize(
+    ("device", "engine"), [("cpu", "c"), pytest.param("cuda", "auto", marks=pytest.mark.gpu)]
+)
+def test_what_a_policy_does_alone_is_a_motion_that_tracking_reads(rising, tmp_path, device, engine):
     help_ = AssistRoot(file=rising, **FIELDS)
-    found, model = rolled_out(
-        run_cfg(cfg_of(rising, assist=help_, limit=1.0)), still(), trials=3, note=pytest.fail
-    )
+
+    def roll_out(task, trials):
+        return rolled_out(run_cfg(task, device), still(), trials=trials, note=pytest.fail)
+
+    found, model = roll_out(cfg_of(rising, assist=help_, limit=1.0, engine=engine), trials=3)
     # Without help the box has stayed on the floor all the while, whatever the motion asks for.
     assert (found.success, found.fps) == (1.0, 50.0) and len(found.qpos_FL) == 50
     assert np.abs(found.qpos_FL[:, 2] - 0.1).max() < 2e-3
     assert found.error == pytest.approx(0.09, abs=0.03)
     path = tmp_path / "alone.npz"
     write_motion(path, model, found.qpos_FL, found.fps)
-    again, _ = rolled_out(run_cfg(cfg_of(str(path))), still(), trials=2, note=pytest.fail)
+    again, _ = roll_out(cfg_of(str(path), engine=engine), trials=2)
     assert again.success == 1.0 and again.error < 5e-3
 
 
