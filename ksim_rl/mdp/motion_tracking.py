@@ -310,5 +310,8 @@ class PoseDistance(OfMotion, MetricTerm):
         # All frames of the motion, in the order of the joints.
         poses_FL = view.motion(self.file).joint_pos_FL[:, joints.index]
         own_EL = joints.pos_EL
+        # By matrix products, the default for many frames, near poses would lose their digits, on a GPU all but two.
+        exactly = "donot_use_mm_for_euclid_dist"
+        distance_EF = torch.cdist(own_EL, poses_FL, compute_mode=exactly)
         # Root mean square over joints, at the nearest frame.
-        return torch.cdist(own_EL, poses_FL).amin(-1) / own_EL.shape[-1] ** 0.5
+        return distance_EF.amin(-1) / own_EL.shape[-1] ** 0.5

@@ -170,3 +170,17 @@ def test_the_distance_of_a_pose_is_to_the_nearest_frame_of_the_whole_motion(benc
     found = read(bench, mdp.PoseDistance(file=CLIP, joints=LEGS))
     assert min(expected) > 0.02
     torch.testing.assert_close(found, torch.tensor(expected).float(), atol=1e-4, rtol=0.0)
+
+
+def test_a_pose_of_the_motion_has_no_distance(bench):
+    at(bench, 0.0, 1.0, 3.0, 7.0)
+    mj_model = bench.world.mj_model
+    places = [int(mj_model.joint(name).qposadr[0]) for name in bench.view.joints(LEGS).names]
+    # Frames of the file, of which there are many.
+    frames_FL = np.load(motion_path(CLIP))["qpos"][:, places]
+    assert len(frames_FL) > 100
+    bench.world.qpos_EL[:, places] = torch.tensor(frames_FL[[0, 20, 50, 90]]).float()
+    bench.world.refresh()
+    bench.driver.refreshed()
+    found = read(bench, mdp.PoseDistance(file=CLIP, joints=LEGS))
+    assert found.max() < 1e-6
