@@ -14,6 +14,7 @@ from ksim_rl.checks import naming
 from ksim_rl.conf.registration import MODULE
 from ksim_rl.config.overrides import given_fields, leaves
 from ksim_rl.envs.managers.replaced_fields import check_given
+from ksim_rl.files.reading import MOST_CONFIG_BYTES, read_bytes
 from ksim_rl.trainers import RunCfg
 
 PACKAGE = "# @package"
@@ -52,10 +53,11 @@ def own_files() -> list[OwnFile]:
     found = []
     for place in places:
         for name, package in wanted:
-            path = place / f"{name.removesuffix('.yaml')}.yaml"
+            path = Path(str(place / f"{name.removesuffix('.yaml')}.yaml"))
             # Groups have choices that are no files, too.
             if path.is_file():
-                text = path.read_text(encoding="utf-8")
+                # Hydra has read it before.
+                text = read_bytes(path, limit=MOST_CONFIG_BYTES, follows_links=True).decode()
                 found.append(OwnFile(path=str(path), fields=tuple(_fields(text, package))))
     return found
 

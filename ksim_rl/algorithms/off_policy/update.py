@@ -19,7 +19,7 @@ from ksim_rl.algorithms.gradient_steps import (
     load_optimizer_state,
     optimizer_state,
 )
-from ksim_rl.data import MASK_KEY, OfflineTable, ReplayCfg, ReplayRing
+from ksim_rl.data import MASK_KEY, OfflineTable, ReplayCfg, ReplayRing, offline_keys
 from ksim_rl.device import state_tree
 from ksim_rl.device.capture import Captured
 from ksim_rl.device.compiling import compiled
@@ -162,6 +162,11 @@ class OffPolicyUpdate(RolloutUpdate):
         following = [unravel_key(("next", key)) for key in self._observations]
         return [*self._observations, "action", *following, *self.signals.following]
 
+    @property
+    def _kept_keys(self) -> list[NestedKey]:
+        """The leaves that the replay keeps, where reward and flags have the names that TorchRL gives them."""
+        return offline_keys(self._observations)
+
     def __call__(self, rollout_ET: TensorDictBase) -> None:
         """Learn from a rollout `["E","T"]`, or only keep it while the actions are random."""
         self._rollout_ET = rollout_ET
@@ -194,7 +199,7 @@ class OffPolicyUpdate(RolloutUpdate):
     def _store(self) -> None:
         rollout_ET = self.rollout_ET
         # A recorder of the run may read more: the ring would keep it for each of its env states.
-        self.replay.extend(rollout_ET.select(*self.rollout_keys))
+        self.replay.extend(rollout_ET.select(*self._kept_keys))
         # Unlike on policy, gradient steps need not see the statistics that the actions were drawn with.
         update_normalizers(rollout_ET, self.actor, self.critic)
         # An env that ended an episode anywhere in the rollout explores with another scale of noise from now on.
@@ -324,7 +329,7 @@ class OffPolicyUpdate(RolloutUpdate):
         """Return the state of a replay without leaves that this run does not read, which replays of before held."""
         if "ring" not in replay:
             return replay
-        read = {spell(key) for key in self.rollout_keys}
+        read = {spell(key) for key in self._kept_keys}
         ring = branch(replay, "ring")
         content = branch(ring, "content")
         own = {name: content[name] for name in content if name in read}
