@@ -152,9 +152,10 @@ def lost_worlds_of(results: Sequence[Result]) -> int:
 
 
 def is_reached(row: Row, results: Sequence[Result]) -> bool | None:
-    """Return whether a row reaches all its goals; None where it has none.
+    """Return whether a row reaches all its goals; None where it has none and its evaluations lost nothing.
 
-    Where an evaluation has lost contacts or constraints nothing is reached: its figures are of other physics.
+    Where an evaluation has lost contacts or constraints nothing is reached, goals or not: its figures are of other
+    physics.
     """
     if lost_worlds_of(results):
         return False
