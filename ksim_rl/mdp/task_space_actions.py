@@ -117,13 +117,13 @@ class DifferentialIKAction(ActionTerm):
         jacobian_EKN = jacobian(view, self.site, self.joints)[:, :count]
         unit_KK = torch.eye(count, device=view.device)
         gram_EKK = product(jacobian_EKN, jacobian_EKN.mT) + self.damping**2 * unit_KK
-        step_EN = _transposed(jacobian_EKN, solved(gram_EKK, asked_EK))
-        if self.posture_weight > 0.0:
-            home_EN = self.posture_weight * (view.joints(self.joints).default_pos_EL - target_EN)
-            # Without what would move the site: the projection into the null space of the Jacobian.
-            moves_EK = product(jacobian_EKN, home_EN[..., None])[..., 0]
-            step_EN = step_EN + home_EN - _transposed(jacobian_EKN, solved(gram_EKK, moves_EK))
-        return step_EN
+        if self.posture_weight == 0.0:
+            return _transposed(jacobian_EKN, solved(gram_EKK, asked_EK))
+        home_EN = self.posture_weight * (view.joints(self.joints).default_pos_EL - target_EN)
+        # The way home moves the site as well, which the least squares take back: what is left of it lies in the null
+        # space of the Jacobian.
+        moves_EK = product(jacobian_EKN, home_EN[..., None])[..., 0]
+        return home_EN + _transposed(jacobian_EKN, solved(gram_EKK, asked_EK - moves_EK))
 
     def __call__(self, view: EnvView, action_EK: Float[Tensor, "E K"]) -> None:
         joints = view.joints(self.joints)

@@ -38,8 +38,9 @@ from ksim_rl.physics.height_field.geometry import (
     touch_of_core,
     with_normals,
 )
+from ksim_rl.physics.height_field.parameters import params_of
 from ksim_rl.physics.structs import filled, struct_with
-from ksim_rl.physics.upstream import contact_params, make_frame, write_contact
+from ksim_rl.physics.upstream import make_frame, write_contact
 
 SPHERE, CAPSULE, BOX, HEIGHT_FIELD = (
     int(mjw.GeomType[name]) for name in ("SPHERE", "CAPSULE", "BOX", "HFIELD")
@@ -104,41 +105,6 @@ def core_of(kind: int, size: wp.vec3, center: wp.vec3, turn: wp.mat33) -> Core:
         core.num_edges = 1
         core.corner_step = 4
     return core
-
-
-@wp.func
-def params_of(c: Collisions, pair: int, world: int):
-    """Return the parameters of contacts of a pair, as MuJoCo Warp has them: margin and gap are the second and third."""
-    ground = c.pairs[pair][0]
-    geom = c.pairs[pair][1]
-    geoms, margin, gap, condim, friction, solref, solreffriction, solimp, adhesion = contact_params(
-        c.geom_condim,
-        c.geom_priority,
-        c.geom_solmix,
-        c.geom_solref,
-        c.geom_solimp,
-        c.geom_friction,
-        c.geom_margin,
-        c.geom_gap,
-        c.geom_adhesion,
-        c.pair_dim,
-        c.pair_solref,
-        c.pair_solreffriction,
-        c.pair_solimp,
-        c.pair_margin,
-        c.pair_gap,
-        c.pair_adhesion,
-        c.pair_friction,
-        c.pairs,
-        c.pair_ids,
-        pair,
-        world,
-    )
-    if c.pair_ids[pair][0] < 0 and c.geom_priority[ground] != c.geom_priority[geom]:
-        # The parameters of the geom with priority hold alone, which MuJoCo Warp's function does not know of this one.
-        stronger = wp.where(c.geom_priority[ground] > c.geom_priority[geom], ground, geom)
-        solref = c.geom_solref[world % c.geom_solref.shape[0], stronger]
-    return geoms, margin, gap, condim, friction, solref, solreffriction, solimp, adhesion
 
 
 @wp.func

@@ -19,13 +19,13 @@ import warp as wp
 
 from ksim_rl.physics.height_field.fields import CONTACT_FIELDS, DATA_FIELDS, MODEL_FIELDS
 from ksim_rl.physics.height_field.geometry import corner_of_prism, field_of, prism_of
+from ksim_rl.physics.height_field.parameters import params_of
 from ksim_rl.physics.structs import filled, struct_with
 from ksim_rl.physics.upstream import (
     GEOM_TYPES,
     MJ_MAX_EPAFACES,
     MJ_MAX_EPAHORIZON,
     ccd,
-    contact_params,
     geom_collision_pair,
     make_frame,
     support,
@@ -80,33 +80,9 @@ def append_contacts(c: Searches, slot: int, world: int, pair: int):
     # In the frame of the field, where its lattice is aligned with the axes.
     center = wp.transpose(field_turn) @ (c.geom_xpos[world, geom] - c.geom_xpos[world, ground])
     bound = c.geom_rbound[world % c.geom_rbound.shape[0], geom]
-    geoms, margin, gap, condim, friction, solref, solreffriction, solimp, adhesion = contact_params(
-        c.geom_condim,
-        c.geom_priority,
-        c.geom_solmix,
-        c.geom_solref,
-        c.geom_solimp,
-        c.geom_friction,
-        c.geom_margin,
-        c.geom_gap,
-        c.geom_adhesion,
-        c.pair_dim,
-        c.pair_solref,
-        c.pair_solreffriction,
-        c.pair_solimp,
-        c.pair_margin,
-        c.pair_gap,
-        c.pair_adhesion,
-        c.pair_friction,
-        c.pairs,
-        c.pair_ids,
-        pair,
-        world,
+    geoms, margin, gap, condim, friction, solref, solreffriction, solimp, adhesion = params_of(
+        c, pair, world
     )
-    if c.pair_ids[pair][0] < 0 and c.geom_priority[ground] != c.geom_priority[geom]:
-        # The parameters of the geom with priority hold alone, which MuJoCo Warp's function does not know of this one.
-        stronger = wp.where(c.geom_priority[ground] > c.geom_priority[geom], ground, geom)
-        solref = c.geom_solref[world % c.geom_solref.shape[0], stronger]
     # The bounding sphere rules most pairs out before any search.
     reach = margin + gap
     if center[2] - bound > size[2] + reach or center[2] + bound < -size[3] - reach:
