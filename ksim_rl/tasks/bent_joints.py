@@ -1,8 +1,6 @@
 """Bends a robot's joints at the start of an episode, by poses in which its limbs do not lie inside of each other."""
 
-import hashlib
 from dataclasses import dataclass
-from weakref import WeakKeyDictionary
 
 import mujoco
 import numpy as np
@@ -14,14 +12,10 @@ from ksim_rl.checked import Count, NonNegative, Range, Seed
 from ksim_rl.envs.term import EventTerm
 from ksim_rl.envs.view import EnvView
 from ksim_rl.mdp.fields import OfJoints
-from ksim_rl.physics import World
-from ksim_rl.physics.model_checks import model_bytes
+from ksim_rl.mdp.start_banks import bank_of
 
 # Of each pose of a bank: far more than robots need whose limbs can be apart at all.
 MOST_DRAWS = 1000
-# The banks of this process, so that training and evaluations draw them once, and their copies on devices.
-_DRAWN: dict[tuple[str, bytes], np.ndarray] = {}
-_BANKS: WeakKeyDictionary[World, dict[str, Tensor]] = WeakKeyDictionary()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,29 +38,21 @@ class BendJointsApart(OfJoints, EventTerm):
     bank_seed: Seed = 0
 
     def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> None:
-        known = _BANKS.setdefault(view.world, {})
-        if repr(self) not in known:
-            bank_NL = self._drawn_once(view)
-            # Outside of inference mode: the tensor outlives the mode of the call that comes first.
-            with torch.inference_mode(False):
-                known[repr(self)] = torch.tensor(bank_NL, dtype=torch.float32, device=view.device)
-        pos_EL = known[repr(self)][view.integers(1, 0, self.size - 1)[:, 0]]
         joints = view.joints(self.joints)
-        joints.write_pos(mask_E, pos_EL)
-        joints.write_vel(mask_E, torch.zeros_like(pos_EL))
 
-    def _drawn_once(self, view: EnvView) -> np.ndarray:
-        mj_model = view.world.mj_model
-        key = repr(self), hashlib.sha256(model_bytes(mj_model).tobytes()).digest()
-        if key not in _DRAWN:
-            joints = view.joints(self.joints)
-            _DRAWN[key] = self.draw(
-                mj_model,
+        def drawn() -> np.ndarray:
+            return self.draw(
+                view.world.mj_model,
                 tuple(joints.names),
                 default_M=view.default_qpos_L.double().cpu().numpy(),
                 limits_L2=joints.soft_limits_L2.double().cpu().numpy(),
             )
-        return _DRAWN[key]
+
+        bank_NL = bank_of(view, repr(self), drawn)
+        # A random row of the bank for each env.
+        pos_EL = bank_NL[view.integers(1, 0, self.size - 1)[:, 0]]
+        joints.write_pos(mask_E, pos_EL)
+        joints.write_vel(mask_E, torch.zeros_like(pos_EL))
 
     def draw(
         self,

@@ -1,6 +1,5 @@
 """These events draw the starts of episodes by the rules of the DeepMind Control Suite."""
 
-import hashlib
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -18,6 +17,7 @@ from ksim_rl.checked import NonNegative, Range, Seed, WholeNumber, Within
 from ksim_rl.envs.term import EventTerm
 from ksim_rl.envs.view import EnvView
 from ksim_rl.mdp.constants import array_constant
+from ksim_rl.mdp.start_banks import bank_of
 from ksim_rl.physics import World
 from ksim_rl.scene.names import match_names
 
@@ -25,9 +25,8 @@ from ksim_rl.scene.names import match_names
 MOST_DRAWS = 1000
 # Of states that settle, which are kept for all steps.
 ROWS_AT_ONCE = 256
-# The banks of this process, so that envs of one model draw it once.
-_DRAWN: dict[tuple[str, bytes], np.ndarray] = {}
-_BANKS: WeakKeyDictionary[World, dict[str, Tensor]] = WeakKeyDictionary()
+# Of starts that are drawn on the device, by the text of their rule.
+_BOUNDS: WeakKeyDictionary[World, dict[str, Tensor]] = WeakKeyDictionary()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -98,8 +97,8 @@ class DrawStart(StartRule):
 
     def _device_bounds(self, view: EnvView) -> tuple[Float[Tensor, " L"], Float[Tensor, " L"]]:
         # By world: each has its own default pose and device.
-        known = _BANKS.setdefault(view.world, {})
-        key = f"bounds of {self!r}"
+        known = _BOUNDS.setdefault(view.world, {})
+        key = repr(self)
         if key not in known:
             default_L = view.default_qpos_L.double().cpu().numpy()
             known[key] = array_constant(
@@ -128,28 +127,15 @@ class StartFromBank(StartRule):
     bank_seed: Seed = 0
 
     def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> None:
-        known = _BANKS.setdefault(view.world, {})
-        if repr(self) not in known:
-            bank_NL = self._drawn_once(
-                view.world.mj_model, view.default_qpos_L.double().cpu().numpy()
-            )
-            # Outside of inference mode: the tensor outlives the mode of the call that comes first.
-            with torch.inference_mode(False):
-                known[repr(self)] = torch.tensor(bank_NL, dtype=torch.float32, device=view.device)
+        def drawn() -> np.ndarray:
+            return self.draw(view.world.mj_model, view.default_qpos_L.double().cpu().numpy())
+
+        bank_NL = bank_of(view, repr(self), drawn)
         # A random row of the bank for each env.
-        start_EL = known[repr(self)][view.integers(1, 0, self.size - 1)[:, 0]]
+        start_EL = bank_NL[view.integers(1, 0, self.size - 1)[:, 0]]
         nq = view.world.qpos_EL.shape[1]
         view.write_qpos(mask_E, start_EL[:, :nq])
         view.write_qvel(mask_E, start_EL[:, nq:])
-
-    def _drawn_once(self, mj_model: mujoco.MjModel, default_L: np.ndarray) -> np.ndarray:
-        # The model's bytes: a bank depends on all that physics sees.
-        content = np.empty(mujoco.mj_sizeModel(mj_model), np.uint8)
-        mujoco.mj_saveModel(mj_model, None, content)
-        key = repr(self), hashlib.sha256(content.tobytes()).digest()
-        if key not in _DRAWN:
-            _DRAWN[key] = self.draw(mj_model, default_L)
-        return _DRAWN[key]
 
     def draw(self, mj_model: mujoco.MjModel, default_L: np.ndarray) -> np.ndarray:
         """Return the bank, qpos and qvel of each start, [N, nq + nv]; a ValueError if starts touch again and again."""
