@@ -35,7 +35,7 @@ class OwnFile:
 
 
 def own_files() -> list[OwnFile]:
-    """Return the config files of the job that Hydra runs, without those of this package."""
+    """Return the config files of the job that Hydra runs, without the files of this package."""
     launched = HydraConfig.get()
     places: list[Traversable] = []
     for source in launched.runtime.config_sources:

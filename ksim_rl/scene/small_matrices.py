@@ -38,8 +38,8 @@ def plane_normal(points_EN3: Float[Tensor, "E N 3"]) -> Float[Tensor, "E 3"]:
 
     Distances are measured across the plane, not along z. They lie on none where their variance across it is more than
     a tenth of the second largest one, or where they are not finite. All in closed form, since a decomposition by
-    `torch.linalg` makes the host wait. The eigenvalues are those of a symmetric 3 x 3 matrix (Smith, Communications of
-    the ACM 4(4), 1961, p. 168).
+    `torch.linalg` makes the host wait. The formula gives the eigenvalues of a symmetric 3 x 3 matrix (Smith,
+    Communications of the ACM 4(4), 1961, p. 168).
     """
     # Differences of variances decide: single precision would leave three digits of them.
     points_EN3 = points_EN3.double()

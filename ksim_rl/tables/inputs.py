@@ -95,7 +95,7 @@ class Sources:
         result = self.results / name / f"seed_{seed}.json"
         if not result.exists():
             return fix
-        return f"move {result} away, and {fix} anew"
+        return f"move {result} away, and {fix} again"
 
 
 def _facts(path: Path) -> Result:
@@ -117,7 +117,7 @@ def write_finished(run_folder: Path, result: Result, seed: int) -> None:
 
 
 def clear_finished(run_folder: Path) -> None:
-    """Say in a run folder that its run is not finished any more, as it begins anew."""
+    """Say in a run folder that its run is not finished any more, as it starts again."""
     (run_folder / FINISHED).unlink(missing_ok=True)
 
 

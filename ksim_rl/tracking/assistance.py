@@ -222,7 +222,7 @@ def _best(
         )
     error_E = runner.errors_EM[:, 0] / runner.length_E.clamp_min(1)
     best = int(torch.where(runner.ended_well_E, error_E, torch.inf).argmin())
-    # The last step's state is that of the next start already.
+    # The last step's state already belongs to the next start.
     qpos_FL = runner.qpos_TEL[: int(runner.length_E[best]), best].double().cpu().numpy()
     return Rollout(
         qpos_FL=qpos_FL, fps=1.0 / base.step_dt, success=success, error=float(error_E[best])

@@ -21,7 +21,7 @@ MIN_WIDTH = 16
 # In the order in which the kernels number them.
 ACTIVATIONS = (nn.ELU, nn.ReLU, nn.Tanh, nn.SiLU)
 # A program of the chained kernels holds in registers as a whole the observation and the second hidden layer. The limit
-# is that of a height scan beside the state: more would leave too few registers for the layers.
+# holds a height scan beside the state: more would leave too few registers for the layers.
 CHAINED_OBS = 320
 CHAINED_SECOND = (16, 32, 64, 128, 256)
 MAX_WIDTH = 1024
